@@ -208,9 +208,12 @@ def laws_of(waves: Any) -> list[tuple[PartWaves, slice]]:
 
 
 def is_of_parts(K: AbstractMatrixKernel) -> bool:
-    """Whether all terms of K are `Shared` laws or friction, so that its features are exact."""
+    """Whether the terms of K are `Shared` laws, friction, and constant input matrices.
+
+    Their features are exact.
+    """
     if isinstance(K, Controlled):
-        return is_of_parts(K.drift) and isinstance(K.inputs, KnownMatrix)
+        return is_of_parts(K.drift) and K.has_constant_matrix
     if isinstance(K, UnknownMasses):
         return is_of_parts(K.kernel)
     if isinstance(K, Sum):

@@ -76,10 +76,11 @@ def learn(
     more than the price of its hyperparameters, a second pass estimates the intensity of w, and
     `learn` returns the likelier of the two.
 
-    If K is made of `hk.Shared`, alone or beside `hk.Friction` and unknown masses, `learn` solves
-    twice for the laws, without iterations, in any number of coordinates. It uses weak rows,
-    ∫ φ f dt along a smoothed path, whose cost is linear in n. `solver` and `iterations` then have
-    no effect, and innovations are NaN. With inputs or parameters `learn` iterates.
+    If K is made of `hk.Shared`, alone or beside `hk.Friction`, unknown masses and inputs with a
+    constant input matrix, `learn` solves twice for the laws, without iterations, in any number of
+    coordinates. It uses weak rows, ∫ φ f dt along a smoothed path, whose cost is linear in n.
+    `solver` and `iterations` then have no effect, and innovations are NaN. If the input matrix
+    depends on the state, or `between` or `delay` is to be found, `learn` iterates.
 
     Args:
         K: a matrix-valued kernel, whose hyperparameters are the first guess. `learn` gives a
@@ -158,8 +159,9 @@ def learn(
             mean = kinetic_of_velocities(jnp.ones(runs.dimension // 2))
     drift = known_part(K, mean, runs.dimension, jnp.float64)
     _check_identifiable(K, runs, drift)
-    if are_learned_from_rows(K) and process is None:
-        return learn_laws(K, runs, mean if mean is None else as_pytree(mean), sigma, again)
+    if are_learned_from_rows(K) and process is None and runs.is_decided:
+        mean = mean if mean is None else as_pytree(mean)
+        return learn_laws(K, runs, mean, drift, sigma, again)
     return learn_field(K, runs, mean, drift, sigma, process, solver, max_steps, progress, again)
 
 
@@ -283,7 +285,7 @@ def _per_coordinate(value: Any, n: int, name: str) -> Float[np.ndarray, " n"]:
 
 def _are_forces(K: AbstractMatrixKernel, n: int) -> bool:
     """Whether no scalar kernel of K depends on a momentum."""
-    return all(max(s) < n // 2 for k in K.scalar_kernels for s in k.supports(n))
+    return all(max(s, default=0) < n // 2 for k in K.scalar_kernels for s in k.supports(n))
 
 
 def _unknown_masses(K: AbstractMatrixKernel, n: int) -> AbstractMatrixKernel:

@@ -9,6 +9,7 @@ the rows with f(x), or with a difference of H. Then
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -19,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
 
 from hamkernel import _require as require
 from hamkernel._features import is_of_parts
-from hamkernel._fields.base import AbstractField, FieldSum, Mean, root
+from hamkernel._fields.base import AbstractField, FieldSum, Mean, map_states, root
 from hamkernel._fields.joined import AbstractJoinedField, FamilyField, known_of, learned_field
 from hamkernel._gram import components
 from hamkernel._kernels.base import Invariance, Scaled
@@ -173,7 +174,13 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         """
         conditional, rows = self.conditional, self.conditional.rows
         field = conditional.field
-        residual = field.residual.ravel() / rows.scale
+        if field.residual.size:
+            residual = field.residual.ravel() / rows.scale
+        else:  # features keep the residuals of velocities alone
+            on_states = (
+                partial(map_states, f) for f in (field._velocity, field._learned_potential)
+            )
+            residual = rows.y - rows.contrast(rows.evaluate(*on_states))
         return (field.norm**2 + residual @ residual / conditional.ridge) / rows.size
 
     @full_precision

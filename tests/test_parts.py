@@ -529,6 +529,41 @@ def test_masses_are_learned_from_noisy_runs_beside_a_law():
     np.testing.assert_allclose(slope @ field(x), 0.0, atol=1e-7)  # the energy is conserved
 
 
+@pytest.mark.slow
+def test_inputs_are_learned_from_noisy_runs_beside_a_law():
+    """A held force on the first of three sites, whose gain .8 is not known."""
+    rng, t, m = np.random.default_rng(1), 0.05 * np.arange(121), 3
+
+    def rates(_, x, u):
+        d = np.diff(x[:m])
+        pull = d + 0.5 * d**3
+        return np.concatenate([x[m:], np.append(pull, 0) - np.append(0, pull) + [0.8 * u, 0, 0]])
+
+    paths, inputs = [], []
+    for _ in range(2):
+        u, x = np.repeat(1.5 * rng.normal(size=25), 5)[:121], [rng.normal(size=2 * m)]
+        for k in range(120):
+            step = solve_ivp(rates, (t[k], t[k + 1]), x[-1], args=(u[k],), rtol=1e-8, atol=1e-8)
+            x.append(step.y[:, -1])
+        paths.append(np.array(x) + 0.005 * rng.normal(size=(121, 2 * m)))
+        inputs.append(u)
+    law = hk.Shared(hk.Gaussian(2.0), hk.neighbours(m))
+    K = hk.Controlled(hk.Symplectic(law), hk.InputMatrix(1.0, acts_on=(3, 4, 5)))
+    learned = hk.learn(K, hk.Runs(t, paths, inputs=inputs), mass=1.0)
+    assert learned.converged, learned.diagnostics
+    assert _error_of_chain(learned.field) < 0.02
+    G = learned.field.input_matrix(np.zeros(2 * m))[:, 0]
+    np.testing.assert_allclose(G, [0, 0, 0, 0.8, 0, 0], atol=0.02)
+    posterior = learned.posterior
+    assert 0 < posterior.deviation(np.zeros(2 * m), np.ones(1))[3] < 0.02
+    assert 0 < posterior.chi_squared < 2
+    score = learned.score(first=10, draws=0)
+    assert np.all(score.rmse < 0.5 * score.persistence)
+    with pytest.warns(UserWarning, match="do not use this field"):  # negative control
+        backwards = hk.learn(K, hk.Runs(t, paths, inputs=[u[::-1] for u in inputs]), mass=1.0)
+    assert backwards.log_evidence < learned.log_evidence - 100
+
+
 def test_masses_that_are_known_and_unknown_and_friction_without_momenta_are_refused():
     runs = chain_runs(np.ones(4), 0.0, 0.01, seed=0)
     with pytest.raises(TypeError, match="give one of the two"):

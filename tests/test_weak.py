@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 
 import hamkernel as hk
 from hamkernel._report import script
+from hamkernel._runs.runs import lines_in_intervals, values
 from hamkernel._runs.smoothing import Process, smooth
 from hamkernel._weak import rows as weak
 
@@ -55,6 +56,19 @@ def test_the_conditioned_path_is_that_of_the_kalman_smoother():
     assert np.diagonal(T)[:30].max() < np.diagonal(S)[:30].max()
 
 
+@pytest.mark.parametrize(("between", "atol"), [("held", 5e-3), ("linear", 5e-4), ("smooth", 5e-4)])
+def test_inputs_at_nodes_give_the_integrals_of_inputs(between, atol):
+    t, nodes, fine = 0.7 * np.arange(36), np.arange(25.0), (np.arange(24000) + 0.5) / 1000
+    u = np.sin(2 * np.pi * t / 5 + 1)[:, None]
+    at_nodes = weak.inputs_at_nodes(lines_in_intervals(t, u, nodes, between))
+
+    def windows(s):
+        return weak._bump(s / 12 - 1)[0] * np.array([np.ones_like(s), np.sin(s / 5)])
+
+    wanted = windows(fine) @ values(t, u, fine, between) / 1000
+    np.testing.assert_allclose(windows(nodes) @ at_nodes, wanted, atol=atol * 12)
+
+
 def pendulum(x):
     """Momentum 2v and force 3 sin q, so that 2a + 3 sin q is the torque."""
     q, v = x
@@ -71,7 +85,8 @@ def one_piece(path):
     targets = np.zeros((1, 2, 1))
     windows = phi * step, slope / half
     overlap, owner = phi @ phi.T * step, np.zeros(1, int)
-    return weak.Pieces(path[None], roots, owner, *windows, overlap, targets, inside, step)
+    inputs = np.zeros((1, nodes, 0))
+    return weak.Pieces(path[None], roots, owner, *windows, overlap, targets, inside, inputs, step)
 
 
 def test_weak_rows_are_averages_of_the_torque_and_their_covariance_is_to_first_order():

@@ -15,6 +15,7 @@ from hamkernel._gram_operator import placed_product
 from hamkernel._kernels.base import Point, Points
 from hamkernel._machine import map_devices, precise_jit, row_sharding, shard, to_caller_sharding
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
+from hamkernel._structures.joined import AbstractJoinedKernel
 from hamkernel._structures.structure import AbstractPotentialKernel
 
 
@@ -200,7 +201,8 @@ class FeatureField(AbstractField):
 
     @property
     def dimension(self) -> int:
-        return self.residual.shape[-1]
+        K, n = self.kernel, self.residual.shape[-1]
+        return n + K.input_count if isinstance(K, AbstractJoinedKernel) else n
 
     def _velocity(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         return _field_at(self.features, x, self.weights)

@@ -100,9 +100,7 @@ class AbstractJoinedField(AbstractField):
 
     @property
     def dimension(self) -> int:
-        if isinstance(self.whole, KernelField):  # whose points are (x, u)
-            return self.whole.coefficients.shape[-1]
-        return self.whole.dimension
+        return self.kernel.outputs(self.whole.dimension)
 
     @property
     def _next(self) -> str:

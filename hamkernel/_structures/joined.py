@@ -273,6 +273,12 @@ class Controlled(AbstractJoinedKernel):
         return self.inputs if isinstance(self.inputs, KnownMatrix) else None
 
     @property
+    def has_constant_matrix(self) -> bool:
+        """Whether the input matrix is known, or unknown and constant."""
+        k = None if isinstance(self.inputs, KnownMatrix) else self.inputs.kernel
+        return k is None or isinstance(k.kernel if isinstance(k, Scaled) else k, Constant)
+
+    @property
     def conserves(self) -> bool:
         """False: the inputs do work."""
         return False

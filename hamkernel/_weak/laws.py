@@ -22,7 +22,7 @@ from hamkernel import _require as require
 from hamkernel._features import AbstractFeatures, features, is_of_parts, part_terms
 from hamkernel._fields.kinetic import Kinetic, kinetic_of_velocities
 from hamkernel._kernels.base import AbstractScalarKernel, ScalarSum
-from hamkernel._kernels.built_in import Matern
+from hamkernel._kernels.built_in import Constant, Matern
 from hamkernel._kernels.parts import Laws, Shared, alike
 from hamkernel._learned.diagnostics import FitQuality, diagnostics_of_rows
 from hamkernel._learned.free_run import Stretches, relative_error, stretches
@@ -36,6 +36,7 @@ from hamkernel._solvers.lagrangian import ridge_solution
 from hamkernel._solvers.triangle import append_rows, columns_used, regression_loss
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.completed import complete, has_constant_parts
+from hamkernel._structures.joined import Controlled, InputMatrix
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import AbstractPotentialKernel
 from hamkernel._tuning.minimiser import best_in_box, inside_box
@@ -81,14 +82,21 @@ class EvidenceOfRows(AbstractEvidence):
 class States(eqx.Module):
     """The states x of smoothed channels z: z itself, or (q, p) of z = (q, q̇) with known masses.
 
+    With inputs or parameters u the points of the path are (z, u), and those of the field (x, u).
+
     Attributes:
         mass: the mass of each position, shape (m,); None where z is x.
+        dimension: the number n of coordinates of a state.
     """
 
     mass: Float[Array, " m"] | None
+    dimension: int = eqx.field(static=True)
 
-    def __call__(self, z: Float[Array, " z"]) -> Float[Array, " n"]:
-        return z if self.mass is None else z * jnp.append(jnp.ones_like(self.mass), self.mass)
+    def __call__(self, z: Float[Array, " z"]) -> Float[Array, " d"]:
+        if self.mass is None:
+            return z
+        ones = jnp.ones_like(self.mass)
+        return z * jnp.concatenate([ones, self.mass, jnp.ones(len(z) - self.dimension)])
 
 
 def _channels(runs: Runs, mean: Any, noise: Any, is_canonical: bool) -> tuple[Channels, States]:
@@ -102,10 +110,10 @@ def _channels(runs: Runs, mean: Any, noise: Any, is_canonical: bool) -> tuple[Ch
         values, slopes = [x[:, :m] for x in X], [x[:, m:] / mass[None] for x in X]
         if noise is not None:
             noise = np.stack([noise[:m], noise[m:] / mass])
-        state = States(jnp.asarray(mass))
+        state = States(jnp.asarray(mass), n)
     else:
         groups = [np.arange(m), np.arange(m, n)] if is_canonical else [np.arange(n)]
-        values, slopes, state = X, [np.full(x.shape, np.nan) for x in X], States(None)
+        values, slopes, state = X, [np.full(x.shape, np.nan) for x in X], States(None, n)
         noise = None if noise is None else np.stack([noise, noise])
     if noise is not None:  # alike channels have one
         noise = noise.copy()
@@ -138,7 +146,8 @@ def interpolate_laws(K: AbstractMatrixKernel) -> Any:
     b(·, C) b(C, C)⁻¹ L a for the basis b, a Matérn kernel as long as the range of the centres. With
     64 centres −log p of the rows of ten Lennard-Jones particles is off by .7 or less, for
     lengthscales from a quarter of the likeliest to the likeliest. With half, a quarter and an
-    eighth of this length it is off by up to 1, 4 and 11.
+    eighth of this length it is off by up to 1, 4 and 11. An unknown input matrix gets the prior
+    variance 1.
     """
 
     def is_potential(node: Any) -> bool:
@@ -151,7 +160,15 @@ def interpolate_laws(K: AbstractMatrixKernel) -> Any:
         terms = map(_interpolant, laws)
         return eqx.tree_at(lambda node: node.kernel, node, ScalarSum(tuple(terms)))
 
-    return jax.tree.map(interpolate, K, is_leaf=is_potential)
+    K = jax.tree.map(interpolate, K, is_leaf=is_potential)
+    if _unknown_matrix(K) is not None:
+        return eqx.tree_at(lambda K: K.inputs.kernel, K, Constant())
+    return K
+
+
+def _unknown_matrix(K: AbstractMatrixKernel) -> InputMatrix | None:
+    """The prior of a constant input matrix; None if there is none, or the matrix is known."""
+    return K.inputs if isinstance(K, Controlled) and K.known_matrix is None else None  # pyright: ignore
 
 
 def _interpolant(law: Shared) -> Any:
@@ -162,7 +179,8 @@ def _interpolant(law: Shared) -> Any:
 
 def change_basis(F: Float[Array, "N r"], K: AbstractMatrixKernel, n: int) -> Float[Array, "N r"]:
     """The rows F T of K from the rows F of `interpolate_laws(K)`: T = L₀⁻¹L, L₀L₀ᵀ = b(C, C)."""
-    laws = _features_of(K, n).laws()
+    basis: Any = _features_of(K, n)
+    laws = basis.laws()
     shared = [waves.kernel for waves, _ in laws]
     terms = [Shared(law.kernel, law.parts, np.asarray(law.centres)) for law in shared]
     for at in alike(terms):
@@ -172,11 +190,14 @@ def change_basis(F: Float[Array, "N r"], K: AbstractMatrixKernel, n: int) -> Flo
         T = T * jnp.sqrt(jnp.stack([waves.scale for waves, _ in laws[at]]))[:, None, None]
         columns = np.array([np.arange(place.start, place.stop) for _, place in laws[at]])
         F = F.at[:, columns].set(jnp.einsum("nlm,lmk->nlk", F[:, columns], T))
+    if (G := _unknown_matrix(K)) is not None:
+        F = F.at[:, basis.drift.columns :].multiply(jnp.sqrt(G.kernel(jnp.zeros(n), jnp.zeros(n))))
     return F
 
 
 def has_fixed_basis(K: AbstractMatrixKernel) -> bool:
-    """Whether all hyperparameters of K are of the kernels of its laws."""
+    """Whether all hyperparameters of K are of the kernels of its laws and of input matrices."""
+    K = K.state_kernel
     outer = jax.tree.map(
         lambda node: None if isinstance(node, AbstractScalarKernel) else node,
         K,
@@ -195,7 +216,7 @@ class Rows(NamedTuple):
     Attributes:
         pieces: the smoothed runs.
         state: the map from the channels to states.
-        mean: the known part of the field.
+        mean: the known part of the field, a function of its points.
         of_rows: the coordinates that have rows.
     """
 
@@ -211,15 +232,16 @@ class Rows(NamedTuple):
 
     @property
     def dimension(self) -> int:
-        """The number n of coordinates of a state."""
-        return jax.eval_shape(self.state, self.pieces.path[0, 0]).shape[0]
+        """The number d of coordinates of the points of the field, inputs included."""
+        return self.pieces.path.shape[2]
 
     def law(self, field: Any) -> Any:
         """d/dt x − field(x) − mean(x) = 0 as `weak_rows` takes it."""
 
         def law(z):
-            x = self.state(z)
-            drift = sum((f(x) for f in (field, self.mean) if f is not None), jnp.zeros_like(x))
+            s = self.state(z)
+            x = s[: self.state.dimension]
+            drift = sum((f(s) for f in (field, self.mean) if f is not None), jnp.zeros_like(x))
             return x[self.of_rows], -drift[self.of_rows]
 
         return law
@@ -259,7 +281,7 @@ class Design(eqx.Module):
         triangle: the triangle, shape (r + 1, r + 1); None if other hyperparameters change the rows.
         rows: the rows, and the factors of their covariance; None if there is a triangle.
         count: the number of rows.
-        dimension: the number of coordinates of a state.
+        dimension: the number of coordinates of a point of the field, inputs included.
     """
 
     triangle: Float[Array, "k k"] | None
@@ -315,8 +337,8 @@ def _solve(model: LawModel, design: Design) -> tuple[Float[Array, " r"], Float[A
 
 @compiled_by_size
 def _compress(rows: Rows, L, F: Float[Array, "B W m r"]):
-    """All rows as r orthonormal combinations: weights (r, Q, n) at points (Q, n), targets (r,)."""
-    p, n = rows.pieces, rows.dimension
+    """All rows as r orthonormal combinations: weights (r, Q, n) at points (Q, d), targets (r,)."""
+    p, n = rows.pieces, rows.state.dimension
     Q, _ = jnp.linalg.qr(whiten(L, F))
 
     def back(both):
@@ -354,15 +376,16 @@ class Found(NamedTuple):
     used: float
 
 
-def find_laws(K: AbstractMatrixKernel, runs: Runs, mean: Any, noise: Any) -> Found:
-    """The laws by two solves."""
-    n = runs.dimension
+def find_laws(K: AbstractMatrixKernel, runs: Runs, mean: Any, known: Any, noise: Any) -> Found:
+    """The laws by two solves; `known` is `mean` and a known input matrix at points of the field."""
+    n, d = runs.dimension, runs.dimension + runs.input_count
     channels, state = _channels(runs, mean, noise, K.has_hamiltonian)
     smooth = smoothed_pieces(runs, channels)
+    pieces = smooth.pieces
+    pieces = pieces._replace(path=np.concatenate([pieces.path, pieces.inputs], axis=2))
     unit = np.ones(n) if state.mass is None else np.append(np.ones(n // 2), state.mass)
     states, sigma = [x[:, :n] * unit[None] for x in smooth.states], smooth.noise.ravel()[:n] * unit
-    X = np.concatenate(states)
-    K = complete(K, jnp.asarray(X), n)
+    K = complete(K, jnp.asarray(np.concatenate(states)), n)
     depends = sorted(set().union(*(s for k in K.scalar_kernels for s in k.supports(n))))
     if state.mass is not None and depends[-1] >= n // 2:
         raise ValueError(
@@ -370,26 +393,28 @@ def find_laws(K: AbstractMatrixKernel, runs: Runs, mean: Any, noise: Any) -> Fou
             f"of {n} coordinates (q, p). If all of them are positions, give a mass for each: "
             f"mass=np.ones({n})."
         )
-    of_rows = _moving_coordinates(K, X)
-    rows = Rows(smooth.pieces, state, mean, of_rows)
+    points = np.asarray(jax.vmap(state)(jnp.asarray(pieces.states())))
+    of_rows = _moving_coordinates(K, np.append(points[:, :n], np.ones((len(points), d - n)), 1))
+    rows = Rows(pieces, state, known, of_rows)
     model = LawModel(K, jnp.asarray(np.log(2.0)))
-    low, high, starts, error = _box(model, X, rows)
+    low, high, starts, error = _box(model, points, rows)
     deviation = jnp.full(len(of_rows), _EXACT * error)
     fixed = _basis_rows(rows, K) if has_fixed_basis(K) else None
     L, losses = _factors(rows, None, deviation), []
     for is_last in (False, True):
         triangle = None if fixed is None else _triangle(rows, L, fixed)
-        design = Design(triangle, (rows, L) if fixed is None else None, rows.count, n)
+        design = Design(triangle, (rows, L) if fixed is None else None, rows.count, d)
         h, loss = _search(model, design, starts, low, high)
         model, starts = model.with_flat(h), starts.at[0].set(h)
         losses.append(float(loss))
         weights, used = _solve(model, design)
         if not is_last:
-            basis = _features_of(interpolate_laws(model.kernel), n)
+            basis = _features_of(interpolate_laws(model.kernel), d)
             L = _factors(rows, _FieldOfWeights(basis, weights), deviation)
     F = _basis_rows(rows, model.kernel) if fixed is None else fixed
     points, weights, targets = _compress(rows, L, F)
-    observations = Functionals(points[None], weights[None], targets[None])
+    inputs = {K.input_name: points[None, :, n:]} if d > n else {}
+    observations = Functionals(points[None, :, :n], weights[None], targets[None], **inputs)
     count = int(rows.count)
     return Found(model, observations, states, sigma, (losses[0], losses[1]), count, float(used))
 
@@ -409,7 +434,7 @@ def _moving_coordinates(K: AbstractMatrixKernel, X: Float[np.ndarray, "N n"]) ->
 
 
 @compiled_by_size
-def _largest_features(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, " n"]:
+def _largest_features(K: AbstractMatrixKernel, X: Float[Array, "N d"]) -> Float[Array, " n"]:
     return jnp.abs(_features_of(K, X.shape[1])(X)).max(axis=(0, 2))
 
 
@@ -439,23 +464,25 @@ def _box(model: LawModel, X, rows: Rows):
 
 
 def are_learned_from_rows(K: AbstractMatrixKernel) -> bool:
-    """Whether all of K is made from laws that many parts share, and friction, for states alone."""
-    return is_of_parts(K) and not K.takes_inputs
+    """Whether all of K is made from laws that many parts share, friction, and constant inputs."""
+    return is_of_parts(K)
 
 
 def learn_laws(
     K: AbstractMatrixKernel,
     runs: Runs,
     mean: Any,
+    known: Any,
     noise: Float[np.ndarray, " n"] | None,
     again: Callable[..., Learned],
 ) -> Learned:
     """`learn` for laws that many parts share; see there."""
     n = runs.dimension
-    solution = find_laws(K, runs, mean, noise)
+    solution = find_laws(K, runs, mean, known, noise)
     scatter, count = float(jnp.exp(solution.model.log_scatter)), len(solution.observations.targets)
-    if isinstance(solution.model.kernel, UnknownMasses) and isinstance(mean, Kinetic):
-        mean = kinetic_of_velocities(solution.model.kernel.masses)
+    inner = solution.model.kernel.state_kernel
+    if isinstance(inner, UnknownMasses) and isinstance(mean, Kinetic):
+        mean = kinetic_of_velocities(inner.masses)
     posterior = condition(
         solution.model.kernel, solution.observations, regularization=scatter**2 / count, mean=mean
     )
@@ -504,7 +531,7 @@ class _Log(NamedTuple):
 
     times: Float[np.ndarray, " T"]
     states: Float[np.ndarray, "T n"]
-    inputs: Float[np.ndarray, "S 2 0"]
+    inputs: Float[np.ndarray, "S 2 m"]
 
 
 def _quality(
@@ -517,10 +544,11 @@ def _quality(
     speed = np.sqrt(np.mean(np.concatenate(slopes) ** 2, axis=0))
     spacing = np.median(np.concatenate([np.diff(t) for t in times]))
     swing = 2 * np.pi * np.median(scale / np.maximum(speed, np.finfo(float).tiny)) / spacing
-    logs = [_Log(t, x, np.zeros((len(t) - 1, 2, 0))) for t, x in zip(times, measured, strict=True)]
+    pairs = enumerate(zip(times, measured, strict=True))
+    logs = [_Log(t, x, runs.input_lines(r, t)) for r, (t, x) in pairs]
     part = stretches(logs, states, int(np.clip(2 * swing, 4, 64)))
     part = Stretches(*(item[:: max(len(part.starts) // 8, 1)] for item in part))
-    free = solution.count - solution.used
+    free, whole = solution.count - solution.used, getattr(field, "whole", field)  # of points (x, u)
     scatter = float(jnp.exp(solution.model.log_scatter))
     return FitQuality(
         names=runs.coordinate_names,
@@ -542,8 +570,8 @@ def _quality(
         count=2,
         settled=True,
         swing=float(swing),
-        driven=False,
-        free_run=relative_error(np.asarray(_run_freely(field, part)), part, scale),
+        driven=runs.inputs is not None,
+        free_run=relative_error(np.asarray(_run_freely(whole, part)), part, scale),
     )
 
 
@@ -551,22 +579,25 @@ def _quality(
 def _run_freely(field: Any, part: Stretches) -> Float[Array, "S L n"]:
     """The states at the ends of all intervals, by four steps of Runge and Kutta in each."""
 
-    def one(x, spans):
-        def across(x, span):
+    def one(x, spans, inputs):
+        def across(x, both):
+            span, (first, last) = both
             h = span / 4
 
-            def stage(state, shares):  # k₁, k₂, k₃ and k₄ in turn
-                x, k, total = state
-                k = field(x + h * shares[0] * k)
-                return (x, k, total + h * shares[1] * k), None
+            def step(x, i):
+                def stage(state, shares):  # k₁, k₂, k₃ and k₄ in turn
+                    x, k, total = state
+                    u = first + (i + shares[0]) / 4 * (last - first)
+                    k = field(jnp.append(x + h * shares[0] * k, u))
+                    return (x, k, total + h * shares[1] * k), None
 
-            def step(x, _):
                 (_, _, x), _ = jax.lax.scan(stage, (x, jnp.zeros_like(x), x), _RUNGE_KUTTA)
                 return x, None
 
-            x, _ = jax.lax.scan(step, x, length=4)
+            x, _ = jax.lax.scan(step, x, jnp.arange(4.0))
             return x, jnp.where(jnp.isfinite(x), x, jnp.inf)
 
-        return jax.lax.scan(across, x, spans)[1]
+        return jax.lax.scan(across, x, (spans, inputs))[1]
 
-    return jax.lax.map(lambda both: one(*both), (jnp.asarray(part.starts), jnp.asarray(part.spans)))
+    stretches = jnp.asarray(part.starts), jnp.asarray(part.spans), jnp.asarray(part.inputs)
+    return jax.lax.map(lambda stretch: one(*stretch), stretches)

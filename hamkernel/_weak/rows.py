@@ -78,6 +78,8 @@ class Pieces(NamedTuple):
         overlap: ∫ φ_r φ_s dt, shape (W, W).
         targets: ∫ φ c dt, shape (B, W, m).
         inside: whether a window is inside its run, shape (B, W).
+        inputs: the inputs u at the nodes as `inputs_at_nodes` has them, or the parameters of the
+            run, shape (B, P, m).
         spacing: the time between samples, shape ().
     """
 
@@ -89,6 +91,7 @@ class Pieces(NamedTuple):
     overlap: Float[np.ndarray, "W W"]
     targets: Float[np.ndarray, "B W m"]
     inside: Bool[np.ndarray, "B W"]
+    inputs: Float[np.ndarray, "B P m"]
     spacing: float
 
     def states(self) -> Float[np.ndarray, "N Z"]:
@@ -139,7 +142,7 @@ def smoothed_pieces(runs: Runs, channels: Channels) -> Smoothed:
     centres = half * (1 + np.arange(W))
     P = half * (W + 1) + 1
     phi, slope = _bump((np.arange(P)[None] - centres[:, None]) / half)
-    path, roots, inside, targets = [], [], [], []
+    path, roots, inside, inputs, targets = [], [], [], [], []
     for r, (t, duration) in enumerate(zip(times, durations, strict=True)):
         # Windows of two pieces do not overlap, so we treat their errors as independent. 1e-9 allows
         # for rounding.
@@ -150,6 +153,7 @@ def smoothed_pieces(runs: Runs, channels: Channels) -> Smoothed:
             path.append(z)
             roots.append(errors)
             inside.append(at[centres + half] <= t[-1] + 1e-9 * step)
+            inputs.append(inputs_at_nodes(runs.input_lines(r, at)))
             targets.append(_integrals(runs, r, at, centres, half * step, C))
     # We pad to a power of two, so that XLA does not recompile for other data.
     k = power_of_two(max(E.shape[1] for piece in roots for E in piece))
@@ -163,6 +167,7 @@ def smoothed_pieces(runs: Runs, channels: Channels) -> Smoothed:
         phi @ phi.T * step,
         np.where(is_inside[:, :, None], np.array(targets), 0.0),
         is_inside,
+        np.array(inputs),
         float(np.median(np.concatenate([np.diff(t) for t in times]))),
     )
     along = [
@@ -261,6 +266,19 @@ def _bump(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return rest**5, -10 * s * rest**4
 
 
+def inputs_at_nodes(lines: Float[np.ndarray, "P-1 2 m"]) -> Float[np.ndarray, "P m"]:
+    """Values u_p for which Σ g_p u_p is the integral of g u over the step, for a smooth g.
+
+    The means of u, weighted with the linear interpolants of the nodes, are right for a linear g
+    even if u jumps. The second difference removes their error u″/12 of a smooth u.
+    """
+    first, last = lines[:, 0], lines[:, 1]
+    means = np.pad(first / 3 + last / 6, ((0, 1), (0, 0)))
+    means[1:] += first / 6 + last / 3
+    means[1:-1] -= np.diff(means, 2, axis=0) / 12
+    return means
+
+
 def _integrals(runs, r: int, at, centres, half_width: float, m: int) -> Float[np.ndarray, "W m"]:
     """∫ φ u dt of the inputs u of run r, as lines between the nodes `at`."""
     lines = runs.input_lines(r, at)
@@ -344,7 +362,8 @@ def weak_rows(law: Law, pieces: Pieces) -> Float[Array, "B W m *r"]:
 
 def path_covariance(law: Law, pieces: Pieces) -> Float[Array, "B R R"]:
     """D S Dᵀ of the R = W m rows of each piece, for a law with known weights and m components."""
-    C, Z = len(pieces.owner), pieces.path.shape[2]
+    C, P = len(pieces.owner), pieces.path.shape[1]
+    Z = C * pieces.roots.shape[2] // P  # without the inputs, which are known
 
     def piece_result(piece):
         path, roots = piece

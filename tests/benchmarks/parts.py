@@ -27,8 +27,7 @@ Seeds 0, 1 and 2, all usable: `film 30` .0054, .0050, .0040 of the depth, .88, .
 two deviations, 31 to 45 s, of which a second call takes a third. `species 10`: the three laws to
 .0038 to .0189, .86 to 1.00 inside two, 43 to 57 s. `masses 5`: masses to .0054, .0019, .0027 (rms),
 38 to 50 s. `damped 8`: the law to .0011, .0020, .0017, .90 to 1.00 inside two, friction to .006 of
-.15, 28 to 42 s. `learn` from two runs of a chain of three sites, with an input of known or unknown
-gains, took 170 to 183 s, most of it compilation: inputs are not learned from weak rows.
+.15, 28 to 42 s.
 
 Hyperparameters of `chain` and `bodies` are guesses, and the noise is given. Guesses are not enough
 for bands: with an amplitude of 100, a two-hundredth of the likeliest, those of `lennard` held .07
