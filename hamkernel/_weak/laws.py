@@ -376,8 +376,10 @@ class Found(NamedTuple):
     used: float
 
 
-def find_laws(K: AbstractMatrixKernel, runs: Runs, mean: Any, known: Any, noise: Any) -> Found:
-    """The laws by two solves; `known` is `mean` and a known input matrix at points of the field."""
+def find_laws(
+    K: AbstractMatrixKernel, runs: Runs, mean: Any, known_field: Any, noise: Any
+) -> Found:
+    """The laws by two solves; `known_field` is `mean` plus G u of a known input matrix G."""
     n, d = runs.dimension, runs.dimension + runs.input_count
     channels, state = _channels(runs, mean, noise, K.has_hamiltonian)
     smooth = smoothed_pieces(runs, channels)
@@ -395,7 +397,7 @@ def find_laws(K: AbstractMatrixKernel, runs: Runs, mean: Any, known: Any, noise:
         )
     points = np.asarray(jax.vmap(state)(jnp.asarray(pieces.states())))
     of_rows = _moving_coordinates(K, np.append(points[:, :n], np.ones((len(points), d - n)), 1))
-    rows = Rows(pieces, state, known, of_rows)
+    rows = Rows(pieces, state, known_field, of_rows)
     model = LawModel(K, jnp.asarray(np.log(2.0)))
     low, high, starts, error = _box(model, points, rows)
     deviation = jnp.full(len(of_rows), _EXACT * error)
@@ -472,13 +474,13 @@ def learn_laws(
     K: AbstractMatrixKernel,
     runs: Runs,
     mean: Any,
-    known: Any,
+    known_field: Any,
     noise: Float[np.ndarray, " n"] | None,
     again: Callable[..., Learned],
 ) -> Learned:
     """`learn` for laws that many parts share; see there."""
     n = runs.dimension
-    solution = find_laws(K, runs, mean, known, noise)
+    solution = find_laws(K, runs, mean, known_field, noise)
     scatter, count = float(jnp.exp(solution.model.log_scatter)), len(solution.observations.targets)
     inner = solution.model.kernel.state_kernel
     if isinstance(inner, UnknownMasses) and isinstance(mean, Kinetic):
@@ -548,7 +550,7 @@ def _quality(
     logs = [_Log(t, x, runs.input_lines(r, t)) for r, (t, x) in pairs]
     part = stretches(logs, states, int(np.clip(2 * swing, 4, 64)))
     part = Stretches(*(item[:: max(len(part.starts) // 8, 1)] for item in part))
-    free, whole = solution.count - solution.used, getattr(field, "whole", field)  # of points (x, u)
+    free, joint = solution.count - solution.used, getattr(field, "whole", field)  # of points (x, u)
     scatter = float(jnp.exp(solution.model.log_scatter))
     return FitQuality(
         names=runs.coordinate_names,
@@ -571,7 +573,7 @@ def _quality(
         settled=True,
         swing=float(swing),
         driven=runs.inputs is not None,
-        free_run=relative_error(np.asarray(_run_freely(whole, part)), part, scale),
+        free_run=relative_error(np.asarray(_run_freely(joint, part)), part, scale),
     )
 
 
