@@ -260,7 +260,7 @@ def check_field(
     if throw and require.is_concrete(failed):  # the field need not be taken apart
         return require.value(field, failed, message, RuntimeError)
 
-    def learned_arrays(f: Any) -> list[Array]:
+    def learned_arrays(f: Any) -> list:
         return [getattr(f, name) for name in _LEARNED if getattr(f, name, None) is not None]
 
     values = require.value(learned_arrays(field), failed, message, RuntimeError, throw)
