@@ -197,7 +197,7 @@ def test_learning_from_states_finds_the_ratio():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the innovations are not white")  # p = .0014, one log
+@pytest.mark.filterwarnings("ignore:look at. the innovations are not white")  # one log
 def test_learning_from_driven_states_finds_the_ratio_and_the_gain():
     rng = np.random.default_rng(0)
     ts, starts = np.linspace(0, 6, 31), jnp.asarray(rng.uniform(-1, 1, (6, 4)))
