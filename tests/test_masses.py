@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
+from hamkernel._learn import _unknown_masses
 
 RATIO = 2.5
 S = np.diag([1.0, 1.0, 1.0, RATIO])
@@ -144,6 +145,25 @@ def test_tuning_finds_a_full_matrix():
     start = hk.UnknownMasses(hk.Symplectic(1.0 * hk.Gaussian(1.0)), np.eye(2))
     found = hk.tune(start, X, Y, objective="marginal_likelihood", starts=2)
     np.testing.assert_allclose(found.kernel.masses, M, atol=0.1)
+
+
+def test_positions_of_one_body_have_one_mass():
+    tied = hk.UnknownMasses(hk.Symplectic(G), [2.0, 2.0 * RATIO], labels=(0, 0, 1, 1))
+    masses = [1.0, 1.0, RATIO, RATIO]
+    np.testing.assert_allclose(tied.masses, masses)
+    assert tied.log_masses.shape == (1,)
+    X, Z = np.random.default_rng(0).normal(size=(2, 3, 8))
+    apart = hk.UnknownMasses(hk.Symplectic(G), masses)
+    np.testing.assert_allclose(hk.gram(tied, X, Z), hk.gram(apart, X, Z), atol=1e-12)
+    with pytest.raises(ValueError, match="there are 4 masses: states"):
+        hk.fit(tied, np.ones((9, 4)), np.ones((9, 4)))
+    for masses, labels in (([1, 1], (0, 0, 2)), (np.eye(3), (0, 1, 2)), ([1, 1], ())):
+        with pytest.raises(ValueError, match="the number of its body"):
+            hk.UnknownMasses(hk.Symplectic(G), masses, labels=labels)
+    # `learn` ties the coordinates of a particle of `hk.pairs`.
+    pairs = hk.Symplectic(hk.Shared(G, hk.pairs(3, 2)))
+    assert _unknown_masses(pairs, 12).labels == (0, 0, 1, 1, 2, 2)
+    assert _unknown_masses(hk.Symplectic(G), 12).labels is None
 
 
 def test_what_has_no_masses_to_find_is_refused():

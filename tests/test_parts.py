@@ -564,6 +564,13 @@ def test_inputs_are_learned_from_noisy_runs_beside_a_law():
     assert backwards.log_evidence < learned.log_evidence - 100
 
 
+def test_a_family_of_laws_is_refused_by_learn_at_once():
+    t, X = np.arange(20.0), np.random.default_rng(0).normal(size=(2, 20, 8))
+    runs = hk.Runs(t, list(X), parameters=[0.1, 0.2])
+    with pytest.raises(TypeError, match="does not know families"):
+        hk.learn(hk.Family(hk.Symplectic(CHAIN), hk.Gaussian(1.0)), runs, mass=1.0)
+
+
 def test_masses_that_are_known_and_unknown_and_friction_without_momenta_are_refused():
     runs = chain_runs(np.ones(4), 0.0, 0.01, seed=0)
     with pytest.raises(TypeError, match="give one of the two"):

@@ -447,6 +447,11 @@ class _Pairs(eqx.Module):
         """How many coordinates of a state the parts depend on, the first ones."""
         return self.particles * self.dim
 
+    @property
+    def bodies(self) -> tuple[int, ...]:
+        """The particle of each position."""
+        return tuple(i // self.dim for i in range(self.positions))
+
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, "P 1"]:
         size = self.positions
         if len(x) not in (size, 2 * size):

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
 from hamkernel import _require as require
+from hamkernel._features import is_of_parts
 from hamkernel._fields.base import known_part
 from hamkernel._learned.score import Score, compute_score
 from hamkernel._machine import full_precision
@@ -294,10 +295,11 @@ class Learned(AbstractLearned):
         return self._posterior(on_landmarks=rows > 3000)
 
     def _posterior(self, on_landmarks: bool) -> Posterior:
-        # With inputs, the field as a function of the points (x, u). A field in the features of laws
-        # has no points, and its posterior few unknowns.
+        # With inputs, the field as a function of the points (x, u). A posterior in the features of
+        # laws has few unknowns.
         points = getattr(getattr(self.field, "whole", self.field), "points", None)
-        solver = None if points is None or not on_landmarks else Nystrom(points=points)
+        is_exact = points is None or not on_landmarks or is_of_parts(self.kernel)
+        solver = None if is_exact else Nystrom(points=points)
         assert self.observations is not None
         return condition(
             self.kernel,

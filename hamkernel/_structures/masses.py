@@ -35,23 +35,26 @@ class UnknownMasses(AbstractMatrixKernel):
         kernel: K, a matrix-valued kernel, such as `Symplectic(k)`.
         masses: the first guess of M, for m ≥ 2 degrees of freedom: shape (m,) for a diagonal M,
             (m, m) for a full symmetric positive definite M. The unit does not matter.
+        labels: the number of the body of each position, counted from 0, if a body has several, such
+            as (0, 0, 1, 1) for two particles in a plane. `masses` are then those of the bodies.
 
     Raises:
         TypeError: K is not matrix-valued, or takes inputs or parameters.
         ValueError: a mass is not positive and finite; a matrix is not symmetric and positive
-            definite; or there is only one degree of freedom.
+            definite; there is only one degree of freedom; or labels do not fit.
 
     Example: `hk.tune(hk.UnknownMasses(hk.Symplectic(k), [1.0, 1.0]), X, Y)`, or
     `hk.learn(hk.UnknownMasses(hk.Symplectic(k), np.eye(2)), runs)`.
     """
 
     kernel: AbstractMatrixKernel
-    log_masses: Float[Array, " m-1"]  # log D_aa/D_11 for a ≥ 2
+    log_masses: Float[Array, " b-1"]  # log D_aa/D_11 for a ≥ 2, or of bodies
     coupling: Float[Array, " c"] | None  # the m(m − 1)/2 entries of L below its diagonal, by row
+    labels: tuple[int, ...] | None = eqx.field(static=True)
 
     symplectic: ClassVar[bool] = False  # flows conserve dq ∧ dp, not dq ∧ dq̇
 
-    def __init__(self, kernel: AbstractMatrixKernel, masses: ArrayLike):
+    def __init__(self, kernel: AbstractMatrixKernel, masses: ArrayLike, labels: Any = None):
         self.kernel = matrix_kernel(kernel, "the kernel of UnknownMasses", "Symplectic(k)")
         if self.kernel.takes_inputs:
             raise TypeError(
@@ -70,6 +73,14 @@ class UnknownMasses(AbstractMatrixKernel):
             guess, self.coupling = _factors(guess)
         else:
             guess = require.positive(guess, "masses", "Give one for each degree of freedom.")
+        self.labels = None if labels is None else tuple(int(label) for label in labels)
+        if labels is not None and (
+            self.coupling is not None or set(self.labels or ()) != set(range(len(guess)))
+        ):
+            raise ValueError(
+                f"labels={labels} and there are {len(guess)} masses: for a diagonal M give each "
+                "position the number of its body, counted from 0."
+            )
         self.log_masses = jnp.log(guess[1:] / guess[0])
 
     def __repr__(self) -> str:
@@ -87,11 +98,12 @@ class UnknownMasses(AbstractMatrixKernel):
     @property
     def _diagonal(self) -> Float[Array, " m"]:
         """The diagonal of D, whose first entry is 1."""
-        return jnp.exp(jnp.pad(self.log_masses, (1, 0)))
+        D = jnp.exp(jnp.pad(self.log_masses, (1, 0)))
+        return D if self.labels is None else D[np.array(self.labels)]
 
     def _triangle(self, dtype: Any) -> Float[Array, "m m"]:
         """The unit lower triangle L."""
-        m = len(self.log_masses) + 1
+        m = len(self.log_masses) + 1  # a full M has no labels
         below = jnp.asarray(self.coupling, dtype)
         return jnp.eye(m, dtype=dtype).at[jnp.tril_indices(m, -1)].set(below)
 
@@ -145,7 +157,7 @@ class UnknownMasses(AbstractMatrixKernel):
         return self.kernel.conserves
 
     def check_dimension(self, n: int) -> None:
-        count = len(self.log_masses) + 1
+        count = len(self.labels or ()) or len(self.log_masses) + 1
         if n != 2 * count:
             raise ValueError(
                 f"states have {n} coordinates and there are {count} masses: states (q, q̇) of "
