@@ -35,7 +35,7 @@ from hamkernel._trajectories.search import (
 )
 from hamkernel._trajectories.segments import (
     LONG,
-    SHORT,
+    WINDOW,
     LinearisedSegments,
     equal_pieces,
     given_path,
@@ -184,7 +184,7 @@ def test_the_gradient_of_the_loss_is_that_of_its_values():
 def test_four_windows_of_long_rows_are_as_long_as_the_samples_allow():
     """What adds up along a path, such as friction, is seen in long windows only."""
     rows = rows_of(*arrays(6, 240))
-    for samples, shape in {1300: (6, 192), 600: (6, 96), 100: (4, 24), 30: (2, SHORT)}.items():
+    for samples, shape in {1300: (6, 192), 600: (6, 96), 100: (4, 24), 30: (2, WINDOW)}.items():
         assert windows(rows, samples).counts.shape[:2] == shape
 
 
@@ -192,9 +192,9 @@ def test_four_windows_of_long_rows_are_as_long_as_the_samples_allow():
 def test_a_window_says_what_its_part_of_the_path_says():
     given = arrays(1, 40)
     rows = rows_of(*given)
-    found = windows(rows, 2 * SHORT)
-    assert found.counts.shape == (2, SHORT, 2)
-    first, last = slice(0, SHORT), slice(40 - SHORT, 40)
+    found = windows(rows, 2 * WINDOW)
+    assert found.counts.shape == (2, WINDOW, 2)
+    first, last = slice(0, WINDOW), slice(40 - WINDOW, 40)
     parts = [
         rows_of(*(a[:, part.start : part.stop - (a.shape[1] == 39)] for a in given))
         for part in (first, last)

@@ -139,7 +139,7 @@ def windows(rows: LinearisedSegments, samples: int) -> LinearisedSegments:
     lengths = measured.shape[1] - np.argmax(measured[:, ::-1], axis=1)
     ends = np.where(measured.any(axis=1), lengths, 0)
     # There are few possible lengths, so that few programs are compiled.
-    length = int(ends.max()) if measured.shape[1] < _WINDOW else _WINDOW
+    length = int(ends.max()) if measured.shape[1] < WINDOW else WINDOW
     while 2 * length <= min(int(ends.max()), samples // 4):
         length *= 2
     firsts = [
@@ -247,7 +247,7 @@ def _linearised_along_smoothed(mean, along, good, segments: Segments) -> Lineari
     return rows._replace(missed=jnp.where(good[:, None, None], missed, 0.0))
 
 
-_WINDOW = 12  # samples, the shortest window of a search; 10 gave the same errors
+WINDOW = 12  # samples, the shortest window of a search; 10 gave the same errors
 LONG = 256  # samples, the longest segment: longer ones add little information
 
 
@@ -281,8 +281,8 @@ def make_segments(
     size, length = (padded_count(count, large) for count in (len(pieces), longest))
     # Windows of longer pieces have this length too, so that one program serves both. A large log of
     # short runs has no windows: with this padding 400 runs of 5 samples took 11 s a solve, not 7.
-    if longest <= _WINDOW and not (large and longest == max(len(run.times) for run in runs)):
-        length = min(power_of_two(longest), _WINDOW)
+    if longest <= WINDOW and not (large and longest == max(len(run.times) for run in runs)):
+        length = min(power_of_two(longest), WINDOW)
     filled = []
     for r, start, stop in pieces:
         run, part = runs[r], slice(start, stop)
