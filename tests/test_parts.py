@@ -138,15 +138,21 @@ def test_parts_may_obey_several_laws_with_one_kernel():
     apart = [lambda x: hk.pairs(3, 1)(x)[np.array([0, 2])], hk.pairs(3, 1, among=(0, 2))]
     terms = sum((hk.Shared(k, parts, C) for parts in apart[1:]), hk.Shared(k, apart[0], C))
     x, z = RNG.normal(size=(2, 3))
-    np.testing.assert_allclose(both(x, z), terms(x, z))
-    exact = hk.Shared(k, hk.pairs(3, 1), laws=[0, 1, 0])(x, z)
-    np.testing.assert_allclose(exact, terms(x, z), rtol=1e-4)
-    features = [hk.Shared(k, parts, C).features(jnp.asarray(x)) for parts in apart]
-    np.testing.assert_allclose(both.features(x), np.concatenate(features))
-    np.testing.assert_allclose(both.gradients(x), jax.jacrev(both.features)(x).T, atol=1e-9)
     w = RNG.normal(size=both.columns)
-    slope = Laws((both,)).slope(x, jnp.asarray(w))
-    np.testing.assert_allclose(slope, both.gradients(x) @ w, atol=1e-9)
+
+    @jax.jit  # one program
+    def compared(x, z, w):
+        exact = hk.Shared(k, hk.pairs(3, 1), laws=[0, 1, 0])
+        each = jnp.concatenate([hk.Shared(k, parts, C).features(x) for parts in apart])
+        slopes = both.gradients(x), jax.jacrev(both.features)(x).T, Laws((both,)).slope(x, w)
+        return (both(x, z), terms(x, z), exact(x, z)), (both.features(x), each), slopes
+
+    (value, wanted, exact), features, (gradients, by_ad, slope) = compared(x, z, w)
+    np.testing.assert_allclose(value, wanted)
+    np.testing.assert_allclose(exact, wanted, rtol=1e-4)
+    np.testing.assert_allclose(*features)
+    np.testing.assert_allclose(gradients, by_ad, atol=1e-9)
+    np.testing.assert_allclose(slope, gradients @ w, atol=1e-9)
     assert len(undetermined_terms(hk.CurlFree(both), 3)) == 2
     with pytest.raises(ValueError, match="laws of 3 parts, and there are 6: give"):
         hk.Shared(k, hk.pairs(4, 1), laws=(0, 1, 0))(jnp.ones(4), jnp.ones(4))
@@ -302,15 +308,14 @@ def test_a_law_is_found_in_kernels_with_a_symmetry_and_beside_other_terms():
     r = jnp.linspace(0.5, 2.5, 9)
     F = np.stack([forces(q.reshape(4, 2)).ravel() for q in Q])
     wanted = -(spring(r) - spring(1.0))  # the potential of the force field ∇u
-    for K in (
-        hk.Odd(hk.CurlFree(law)),
+    posterior = hk.condition(hk.Odd(hk.CurlFree(law)), Q, F, 1e-6)
+    kernels = (
         hk.CurlFree(hk.Invariant(law, [reflected])),
         hk.CurlFree(law + 1e-6 * hk.Gaussian(2.0)),
-    ):
-        field = hk.fit(K, Q, F, 1e-8)
-        found = jax.vmap(lambda r, f=field: f.law(r, 1.0))(r)
+    )
+    for field in (posterior.field, *(hk.fit(K, Q, F, 1e-8) for K in kernels)):
+        found = jax.jit(jax.vmap(lambda r, f=field: f.law(r, 1.0)))(r)
         np.testing.assert_allclose(found, wanted, atol=0.02)
-    posterior = hk.condition(hk.Odd(hk.CurlFree(law)), Q, F, 1e-6)
     plain = hk.condition(hk.CurlFree(law), Q, F, 1e-6)
     np.testing.assert_allclose(
         posterior.law_deviation(2.0, 1.0), plain.law_deviation(2.0, 1.0), rtol=1e-3
