@@ -208,7 +208,7 @@ def laws_of(waves: Any) -> list[tuple[PartWaves, slice]]:
 
 
 def is_of_parts(K: AbstractMatrixKernel) -> bool:
-    """Whether the terms of K are `Shared` laws, friction, and constant input matrices.
+    """Whether all terms of K are `Shared` laws, friction, or constant input matrices.
 
     Their features are exact.
     """

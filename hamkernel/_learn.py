@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
+from hamkernel._features import is_of_parts
 from hamkernel._fields.base import known_part
 from hamkernel._fields.kinetic import Kinetic, kinetic, kinetic_of_velocities
 from hamkernel._kernels.functions import as_pytree
@@ -29,7 +30,7 @@ from hamkernel._structures.masses import UnknownMasses
 from hamkernel._trajectories.learn import learn_field
 from hamkernel._trajectories.model import with_amplitude
 from hamkernel._weak.lagrangian import LearnedLagrangian, learn_lagrangian
-from hamkernel._weak.laws import are_learned_from_rows, learn_laws
+from hamkernel._weak.laws import learn_laws
 
 
 @overload
@@ -80,10 +81,10 @@ def learn(
     If K is made of `hk.Shared`, alone or beside `hk.Friction`, unknown masses and inputs with a
     constant input matrix, `learn` solves twice for the laws, without iterations, in any number of
     coordinates. It uses weak rows, ∫ φ f dt along a smoothed path, whose cost is linear in n.
-    `solver` and `iterations` then have no effect, and innovations are NaN. With process noise, such
-    as `process_noise=0`, `learn` iterates: chains of n = 4, 8 and 12 then take 3.5, 7 and 10 times
-    as long, and most laws are two to four times more accurate. It also iterates if the input matrix
-    depends on the state, or if `between` or `delay` is to be found.
+    `solver` and `iterations` then have no effect, and innovations are NaN. If you give
+    `process_noise`, such as 0, `learn` iterates: chains of n = 4, 8 and 12 then take 3.5, 7 and 10
+    times as long, and four laws of five are two to four times more accurate. `learn` also iterates
+    if the input matrix depends on the state, or if `between` or `delay` is to be found.
 
     Args:
         K: a matrix-valued kernel, whose hyperparameters are the first guess. `learn` gives a
@@ -128,11 +129,11 @@ def learn(
 
     Raises:
         TypeError: the runs have inputs and K takes none, or the other way round; K is not
-            matrix-valued, or a `Family` of `hk.Shared` laws; `runs` no Runs, or `solver` no
-            Nystrom. ValueError: the structure does
-            not allow this n; the data do not separate the inputs from the drift; the noise is not
-            positive; a coordinate was never measured and no mean says how it moves the others;
-            float64 is not enabled.
+            matrix-valued, or a `Family` of `hk.Shared` laws; `runs` is no Runs, or `solver` is no
+            Nystrom.
+        ValueError: the structure does not allow this n; the data do not separate the inputs from
+            the drift; the noise is not positive; a coordinate was never measured and no mean says
+            how it moves the others; float64 is not enabled.
 
     Warns:
         UserWarning: at most once. It names the rows of `learned.diagnostics` that fall short, with
@@ -160,14 +161,14 @@ def learn(
     max_steps = require.count(iterations, "iterations")
     if masses:
         K = _unknown_masses(K, runs.dimension)
-        if mean is None and are_learned_from_rows(K) and _are_forces(K, runs.dimension):
+        if mean is None and is_of_parts(K) and _are_forces(K, runs.dimension):
             mean = kinetic_of_velocities(jnp.ones(runs.dimension // 2))
     drift = known_part(K, mean, runs.dimension, jnp.float64)
     _check_identifiable(K, runs, drift)
     # Rows are the cheaper way from n = 4 on. For chains of n = 4, 8 and 12 iterations take 3.5, 7
     # and 10 times as long, for errors of the law of 1.5 to a quarter times those of rows
     # (`tests/benchmarks/parts.py ways 2 4 6`).
-    if are_learned_from_rows(K) and process is None and runs.is_decided:
+    if is_of_parts(K) and process is None and runs.is_decided:
         mean = mean if mean is None else as_pytree(mean)
         return learn_laws(K, runs, mean, drift, sigma, again)
     return learn_field(K, runs, mean, drift, sigma, process, solver, max_steps, progress, again)

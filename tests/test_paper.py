@@ -33,13 +33,8 @@ CHOSEN = {"lengthscale", "regularization", "loss", "seconds", "trajectory_error"
 
 
 def program(out: pathlib.Path, *arguments: str) -> tuple[str, pathlib.Path]:
-    """What the program prints and the folder it fills; strict promotion, warnings as errors.
-
-    It is not compiled as for a user, in CI either: that takes 124 s of CPU time for 72, and changes
-    the tenth digit of the results.
-    """
+    """What the program prints and the folder it fills; strict promotion, warnings as errors."""
     strict = {"JAX_NUMPY_DTYPE_PROMOTION": "strict", "JAX_NUMPY_RANK_PROMOTION": "raise"}
-    strict["XLA_FLAGS"] = os.environ["FAST_XLA_FLAGS"]
     command = [sys.executable, "-W", "error", "-m", "hamkernel", "--out", str(out), *arguments]
     done = subprocess.run(command, env=os.environ | strict, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -35,8 +35,9 @@ class UnknownMasses(AbstractMatrixKernel):
         kernel: K, a matrix-valued kernel, such as `Symplectic(k)`.
         masses: the first guess of M, for m ≥ 2 degrees of freedom: shape (m,) for a diagonal M,
             (m, m) for a full symmetric positive definite M. The unit does not matter.
-        labels: the number of the body of each position, counted from 0, if a body has several, such
-            as (0, 0, 1, 1) for two particles in a plane. `masses` are then those of the bodies.
+        labels: the number of the body of each position, counted from 0, shape (m,), such as
+            (0, 0, 1, 1) for two particles in a plane. `masses` then has one mass for each of the b
+            bodies, shape (b,), and M is diagonal. None: each position has a mass of its own.
 
     Raises:
         TypeError: K is not matrix-valued, or takes inputs or parameters.

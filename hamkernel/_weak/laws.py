@@ -19,7 +19,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 
 from hamkernel import _require as require
-from hamkernel._features import AbstractFeatures, features, is_of_parts, part_terms
+from hamkernel._features import AbstractFeatures, features, part_terms
 from hamkernel._fields.kinetic import Kinetic, kinetic_of_velocities
 from hamkernel._kernels.base import AbstractScalarKernel, ScalarSum
 from hamkernel._kernels.built_in import Constant, Matern
@@ -82,7 +82,7 @@ class EvidenceOfRows(AbstractEvidence):
 class States(eqx.Module):
     """The states x of smoothed channels z: z itself, or (q, p) of z = (q, q̇) with known masses.
 
-    With inputs or parameters u the points of the path are (z, u), and those of the field (x, u).
+    With inputs u, points of the path are (z, u) and points of the field are (x, u).
 
     Attributes:
         mass: the mass of each position, shape (m,); None where z is x.
@@ -396,6 +396,7 @@ def find_laws(
             f"mass=np.ones({n})."
         )
     points = np.asarray(jax.vmap(state)(jnp.asarray(pieces.states())))
+    # Inputs of one: a coordinate that inputs alone move has rows too.
     of_rows = _moving_coordinates(K, np.append(points[:, :n], np.ones((len(points), d - n)), 1))
     rows = Rows(pieces, state, known_field, of_rows)
     model = LawModel(K, jnp.asarray(np.log(2.0)))
@@ -415,8 +416,8 @@ def find_laws(
             L = _factors(rows, _FieldOfWeights(basis, weights), deviation)
     F = _basis_rows(rows, model.kernel) if fixed is None else fixed
     points, weights, targets = _compress(rows, L, F)
-    inputs = {K.input_name: points[None, :, n:]} if d > n else {}
-    observations = Functionals(points[None, :, :n], weights[None], targets[None], **inputs)
+    inputs = points[None, :, n:] if d > n else None
+    observations = Functionals(points[None, :, :n], weights[None], targets[None], inputs=inputs)
     count = int(rows.count)
     return Found(model, observations, states, sigma, (losses[0], losses[1]), count, float(used))
 
@@ -463,11 +464,6 @@ def _box(model: LawModel, X, rows: Rows):
             design.append(np.array(at))
     white = np.sqrt(pieces.overlap[0, 0] * pieces.spacing) / pieces.values[0].sum()
     return *map(jnp.asarray, (low, high, np.array(design))), rms / white
-
-
-def are_learned_from_rows(K: AbstractMatrixKernel) -> bool:
-    """Whether all of K is made from laws that many parts share, friction, and constant inputs."""
-    return is_of_parts(K)
 
 
 def learn_laws(

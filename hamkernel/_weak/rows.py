@@ -78,8 +78,7 @@ class Pieces(NamedTuple):
         overlap: ∫ φ_r φ_s dt, shape (W, W).
         targets: ∫ φ c dt, shape (B, W, m).
         inside: whether a window is inside its run, shape (B, W).
-        inputs: the inputs u at the nodes as `inputs_at_nodes` has them, or the parameters of the
-            run, shape (B, P, m).
+        inputs: the result of `inputs_at_nodes`, shape (B, P, m).
         spacing: the time between samples, shape ().
     """
 

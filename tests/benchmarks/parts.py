@@ -27,10 +27,8 @@ inside two) and by .009 at .03 (seed 0, .61 and .97).
 Seeds 0, 1 and 2, all usable: `film 30` .0054, .0050, .0040 of the depth, .88, .92 and 1.00 inside
 two deviations, 31 to 45 s, of which a second call takes a third. `species 10`: the three laws to
 .0038 to .0189, .86 to 1.00 inside two, 43 to 57 s. `masses 5`: masses to .0047, .0012, .0011 (rms),
-27 to 45 s. Without one mass for both coordinates of a particle the errors are .0054, .0019, .0027;
-a third solve (.0046, .0024, .0011) and windows of .7 lengthscales (.0025, .0014, .0019) change them
-as another draw would. `damped 8`: the law to .0011, .0020, .0017, .90 to 1.00 inside two, friction
-to .006 of .15, 28 to 42 s.
+27 to 45 s; with a mass for each coordinate .0054, .0019, .0027. `damped 8`: the law to .0011,
+.0020, .0017, .90 to 1.00 inside two, friction to .006 of .15, 28 to 42 s.
 `ways` learns the law of a chain from weak rows and by iterations, n twice the number of sites, and
 `driven` a law with an input of unknown gains. The law from rows and by iterations, seeds 0 and 1:
 
