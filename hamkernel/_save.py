@@ -441,7 +441,11 @@ def skeleton(node: Node, codes: list[Any], where: str, supplied: Supplied) -> An
         case {"code": str(name), "leaves": list()}:
             if not codes:
                 raise _Mismatch(f"{where} is {name[:80]!r}, code that is not in the file")
-            return codes.pop(0)
+            code = codes.pop(0)
+            differs = _difference(node, description(code, [], where), where)
+            if differs:
+                raise _Mismatch(differs)
+            return code
         case list():
             below = enumerate(node)
             return tuple(skeleton(child, codes, f"{where}[{i}]", supplied) for i, child in below)

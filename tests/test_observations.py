@@ -237,7 +237,7 @@ EVERYTHING = sum(
 GRID = np.stack(np.meshgrid(*[np.linspace(-3.5, 3.5, 13)] * 2), axis=-1).reshape(-1, 2)
 SOLVERS = {
     "ConjugateGradient": hk.ConjugateGradient(tolerance=1e-12),
-    "Nystrom": hk.Nystrom(points=GRID),
+    "Nystrom": hk.Nystrom(tolerance=100.0, points=GRID),  # half a lengthscale apart leave 76
 }
 
 
@@ -247,7 +247,6 @@ SOLVERS = {
 def test_other_solvers_find_the_field_of_the_dense_one(name):
     exact = hk.fit(K, EVERYTHING, regularization=RIDGE)
     field = hk.fit(K, EVERYTHING, regularization=RIDGE, solver=SOLVERS[name])
-    # What landmarks half a lengthscale apart leave.
     np.testing.assert_allclose(field.evaluate(ASKED), exact.evaluate(ASKED), atol=1e-4)
     np.testing.assert_allclose(field.norm, exact.norm, rtol=1e-4)
     H, H_exact = field.hamiltonian, exact.hamiltonian

@@ -109,7 +109,7 @@ class Prior(eqx.Module):
                 info=info,
                 value_points=S,
                 value_coefficients=b,
-                mean=None if basis is None else feature_draw(K, basis, w, Z.shape[1]),
+                mean=None if basis is None else feature_draw(K, basis, w, A.shape[-1]),
             )
 
         return jax.vmap(one)(A, b, self.coefficients, self.features, self.weights)
@@ -118,7 +118,7 @@ class Prior(eqx.Module):
 def feature_draw(
     K: AbstractMatrixKernel, basis: AbstractFeatures, w: Float[Array, " r"], n: int
 ) -> FeatureField:
-    """The field of one draw of features, at points of n coordinates."""
+    """The field of one draw of features, with n components."""
     zero, unknown = jnp.zeros((), w.dtype), jnp.zeros((0, n), w.dtype)
     field = feature_field(K, basis, w, unknown, zero, SolverInfo("draw"))
     return dataclasses.replace(field, norm=jnp.full_like(zero, jnp.inf))

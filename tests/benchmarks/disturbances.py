@@ -33,7 +33,7 @@ from scipy.signal import savgol_filter
 DT, STEP = 0.02, 1e-6
 
 
-def regressors(kind, q, v, u):
+def regressors(kind, q, v, u) -> np.ndarray:
     columns = [u, np.ones_like(q)]
     if kind == "potential":
         columns += [np.exp(-0.5 * ((q - c) / 0.06) ** 2) for c in np.linspace(q.min(), q.max(), 6)]
@@ -44,7 +44,7 @@ def regressors(kind, q, v, u):
     return np.stack(columns, axis=1)
 
 
-def discretised(log_q, log_tau):
+def discretised(log_q, log_tau) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The transition over a sample, the covariance of what w adds (Van Loan), the prior of w."""
     q = np.exp(log_q)
     if log_tau is None:
@@ -59,14 +59,15 @@ def discretised(log_q, log_tau):
     return F, F @ both[:n, n:], np.diag([1e-2, 1.0, *prior])
 
 
-def whitened(h, data):
+def whitened(h, data) -> tuple[np.ndarray, float]:
     """Rows of independent noise of variance one, the positions last, and ½ log det of it."""
     F, Q, prior = discretised(h[1], h[2] if len(h) == 3 else None)
     push = np.zeros(len(F))
     push[:2] = DT**2 / 2, DT
     rows, constant = [], 0.0
     for q, R in data:
-        P, E = prior, np.zeros((len(F), R.shape[1] + 1))
+        P: np.ndarray = prior
+        E: np.ndarray = np.zeros((len(F), R.shape[1] + 1))
         E[0, -1] = -q[0]
         for i in range(len(q)):
             e = E[0].copy()
@@ -82,15 +83,15 @@ def whitened(h, data):
     return np.array(rows), constant
 
 
-def solved(h, data):
+def solved(h, data) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     rows, constant = whitened(h, data)
     M, r = rows[:, :-1], rows[:, -1]
     system = np.vstack([M, 1e-3 * np.eye(M.shape[1])])
     w = np.linalg.lstsq(system, np.append(r, np.zeros(M.shape[1])), rcond=None)[0]
-    return M, r - M @ w, w, constant + 0.5 * np.sum((r - M @ w) ** 2)
+    return M, r - M @ w, w, float(constant + 0.5 * np.sum((r - M @ w) ** 2))
 
 
-def learned(data, coloured):
+def learned(data, coloured) -> tuple[float, float, float, float, float]:
     def loss(h):
         return 1e9 if h[0] < np.log(STEP / 12**0.5) else solved(h, data)[3]
 
