@@ -414,7 +414,11 @@ class Scaled(AbstractScalarKernel):
         return jnp.exp(self.log_scale)
 
     def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
-        return np.log(1e-5 * amplitude), np.log(1e5 * amplitude)
+        # Gaussians of a length of many extents, which stand for a quartic energy, need amplitudes
+        # that grow with the eighth power of the length: two masses on hardening springs are
+        # likelier by 20 with an amplitude of 1e8 times the middle one than with 1e5 times
+        # (`test_learning_from_states_finds_a_full_matrix`).
+        return np.log(1e-10 * amplitude), np.log(1e10 * amplitude)
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         value = self.kernel(x, z)

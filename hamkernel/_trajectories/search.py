@@ -51,7 +51,7 @@ class Bounds(NamedTuple):
 
 # Entries of K at nodes in the search of hyperparameters: with n = 8 it takes 4 to 10 s.
 # All rows of 20 runs of 50 samples on 128 landmarks have 25 million, and took 46 s.
-_ENTRIES = 1_000_000
+_ENTRIES = 2_000_000
 # Noise in standard deviations of the states. Steps of Runge and Kutta leave as much (`steps_for`),
 # and below it the kernel would bend to their errors: of exact runs σ then fell to 1e-7, rose again
 # from iteration to iteration, and was joined by process noise of 1e-6.

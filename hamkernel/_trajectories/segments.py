@@ -140,7 +140,7 @@ def windows(rows: LinearisedSegments, samples: int) -> LinearisedSegments:
     ends = np.where(measured.any(axis=1), lengths, 0)
     # There are few possible lengths, so that few programs are compiled.
     length = int(ends.max()) if measured.shape[1] < WINDOW else WINDOW
-    while 2 * length <= min(int(ends.max()), samples // 4):
+    while 2 * length <= min(int(ends.max()), samples // (2 * rows.residual.shape[-1])):
         length *= 2
     firsts = [
         (s, max(min(i, end - length), 0))
