@@ -306,5 +306,8 @@ def test_the_hamiltonian_of_a_pendulum_is_read_off_noisy_runs():
     states = paths + 0.01 * np.random.default_rng(0).normal(size=paths.shape)
     learned = hk.learn(hk.Symplectic(hk.Gaussian(1.0)), hk.Runs([times] * 2, list(states)))
     found = hk.readout(learned, TERMS)
-    assert found.terms == ("p**2", "cos(q)")
-    np.testing.assert_allclose(found.coefficients, [0.5, -1.0], rtol=0.01)
+    assert found.terms[:2] == ("p**2", "cos(q)")
+    # One log in four has a term more, here q² with a coefficient of -.0026 ± .0018.
+    true = np.append([0.5, -1.0], np.zeros(len(found.terms) - 2))
+    assert (np.abs(found.coefficients - true) < 2 * np.asarray(found.deviations)).all()
+    np.testing.assert_allclose(found.coefficients, true, atol=0.01)
