@@ -414,9 +414,8 @@ class Scaled(AbstractScalarKernel):
         return jnp.exp(self.log_scale)
 
     def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
-        # Gaussians of a length of many extents, which stand for a quartic energy, need amplitudes
-        # that grow with the eighth power of the length: two masses on hardening springs are
-        # likelier by 20 with an amplitude of 1e8 times the middle one than with 1e5 times
+        # Long Gaussians need an amplitude of the eighth power of their length for a quartic energy.
+        # The log p of two masses on hardening springs rises by 20 from a limit of 1e5 to one of 1e8
         # (`test_learning_from_states_finds_a_full_matrix`).
         return np.log(1e-10 * amplitude), np.log(1e10 * amplitude)
 
