@@ -124,10 +124,12 @@ def windows(rows: LinearisedSegments, samples: int) -> LinearisedSegments:
     """The rows, or windows of them, evenly from all segments, with at most `samples` samples.
 
     The start of a window is unknown, like the start of a segment, so only long windows contain the
-    effects that add up along a path. For variety we take at least 2n windows. With n = 8, the error
-    of the field was .0237 with four windows of 24 samples, and .0086 with eight of 12 samples
-    (`tests/benchmarks/capacity.py chain`). The table has the friction found for a pendulum with
-    friction .2 from six runs of 240 samples, for four seeds:
+    effects that add up along a path. For variety we take at least 2n windows, and eight. With
+    n = 8, the error of the field was .0237 with four windows of 24 samples, and .0086 with eight of
+    12 samples (`tests/benchmarks/capacity.py chain`). With n = 2, four windows of 96 samples of a
+    driven oscillator had six times as many landmarks and no end in 11 minutes. With eight of 48
+    samples `learn` took 3 minutes (`machines.py oscillator`). The table has the friction found for
+    a pendulum with friction .2 from six runs of 240 samples, for four seeds:
 
         windows of 12 samples     .222  .191  .206  .217
         windows of 192 samples    .197  .199  .197  .197   (in the same time)
@@ -142,7 +144,8 @@ def windows(rows: LinearisedSegments, samples: int) -> LinearisedSegments:
     ends = np.where(measured.any(axis=1), lengths, 0)
     # There are few possible lengths, so that few programs are compiled.
     length = int(ends.max()) if measured.shape[1] < WINDOW else WINDOW
-    while 2 * length <= min(int(ends.max()), samples // (2 * rows.residual.shape[-1])):
+    fewest = max(2 * rows.residual.shape[-1], 8)
+    while 2 * length <= min(int(ends.max()), samples // fewest):
         length *= 2
     firsts = [
         (s, max(min(i, end - length), 0))
