@@ -414,10 +414,7 @@ class Scaled(AbstractScalarKernel):
         return jnp.exp(self.log_scale)
 
     def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
-        # Long Gaussians need an amplitude of the eighth power of their length for a quartic energy.
-        # The log p of two masses on hardening springs rises by 20 from a limit of 1e5 to one of 1e8
-        # (`test_learning_from_states_finds_a_full_matrix`).
-        return np.log(1e-10 * amplitude), np.log(1e10 * amplitude)
+        return np.log(1e-5 * amplitude), np.log(1e5 * amplitude)
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         value = self.kernel(x, z)
