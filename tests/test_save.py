@@ -42,6 +42,13 @@ class Turned(eqx.Module):
         return jnp.exp(jnp.cos(self.angle) * (x @ z) / jnp.exp(2 * self.log_scale))
 
 
+class TurnedBack(Turned):
+    """Another kernel with the same arrays."""
+
+    def __call__(self, x, z):
+        return super().__call__(x, -z)
+
+
 def turned(scale=0.7, angle=0.2):
     return Turned(jnp.log(jnp.asarray(scale)), jnp.asarray(angle))
 
@@ -751,6 +758,9 @@ def test_a_kernel_of_the_user_is_given_to_load_as_it_was_to_learn(learned, tmp_p
     assert same(load(tmp_path / "f", kernel=K), mine)  # which has an amplitude more
     with pytest.raises(ValueError, match="not the one saved"):
         load(tmp_path / "f", kernel=hk.Symplectic(cosine))
+    other = TurnedBack(jnp.asarray(0.0), jnp.asarray(0.1))
+    with pytest.raises(ValueError, match="has the velocity"):
+        load(tmp_path / "f", kernel=hk.Symplectic(other))
 
 
 @pytest.mark.parametrize("solver", [None, hk.Nystrom()], ids=["dense", "low rank"])
