@@ -184,7 +184,12 @@ def test_the_gradient_of_the_loss_is_that_of_its_values():
 def test_eight_windows_of_long_rows_are_as_long_as_the_samples_allow():
     """What adds up along a path, such as friction, is seen in long windows only."""
     rows = rows_of(*arrays(6, 240))
-    for samples, shape in {1300: (13, 96), 600: (12, 48), 100: (8, WINDOW), 30: (2, WINDOW)}.items():
+    for samples, shape in {
+        1300: (13, 96),
+        600: (12, 48),
+        100: (8, WINDOW),
+        30: (2, WINDOW),
+    }.items():
         assert windows(rows, samples).counts.shape[:2] == shape
 
 
