@@ -16,9 +16,9 @@ free run of a log that was not learned from (drive: 12 s, in mm; oscillator: the
 in mV), whether it converged, CPU seconds.
 
 Seed 0, errors of gain and drift, share inside, free run. Drive: potential alone 64 %, 101 %, .02,
-283 mm; with friction .08 %, 3.7 %, .23, 2.7 mm (with a rest speed of .1 12 %, 27 %, .30, 20 mm);
+125 mm; with friction .11 %, 3.7 %, .15, 4.0 mm (with a rest speed of .1 12 %, 27 %, .31, 18 mm);
 none converged. A second potential beside friction, of the force and a quarter of the pitch of the
-cogging, which are given to it: 2.2 %, .92 inside.
+cogging, which are given to it: 2.2 %, .89 inside.
 
 Oscillator: held 2.1 %, 13 %, .78, 18 mV, not converged; linear 4.5 %, .33 %, .98, 2.5 mV; smooth
 and auto, which takes it, .01 %, .006 %, 1.00, .48 mV, whose bands are widened by 1.7: splines miss
