@@ -150,7 +150,7 @@ GRID = np.stack(np.meshgrid(*[np.linspace(-3, 3, 9)] * 2), axis=-1).reshape(-1, 
 
 @pytest.mark.slow
 def test_landmarks_tell_what_the_dense_posterior_tells_where_they_are():
-    solver = hk.Nystrom(points=GRID)
+    solver = hk.Nystrom(tolerance=200.0, points=GRID)  # which leaves 110
     posterior = hk.condition(K, hk.Velocities(X, Y) + ENERGIES, regularization=RIDGE, solver=solver)
     for x in (INSIDE, X[0]):
         np.testing.assert_allclose(posterior.field(x), BOTH.field(x), atol=1e-4)
