@@ -500,7 +500,7 @@ def bounds_and_design(
 
     lengths, scales = is_named("lengthscale"), is_named("scale")
     # Long Gaussians need an amplitude of the eighth power of their length for a quartic energy. The
-    # log p of two masses on hardening springs rises by 20 with the limit 1e8 in place of 1e5
+    # log p of two masses on hardening springs rises by 20 with the limit 1e10 in place of 1e5
     # (`test_learning_from_states_finds_a_full_matrix`).
     high = np.where(scales, high + np.log(1e5), high)
     forces = is_named("viscous", "coulomb", "stribeck")
