@@ -5,6 +5,7 @@
 import warnings
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from scipy.integrate import solve_ivp
 import hamkernel as hk
 from hamkernel._learned.diagnostics import _noise_against_motion
 from hamkernel._runs.table import Diagnostic, Diagnostics
+from hamkernel._trajectories.quality import energies
 
 K = hk.Symplectic(hk.Gaussian(1.0))
 FRICTION = hk.Sum(energy=hk.Symplectic(hk.Gaussian(1.0)), friction=hk.Friction())
@@ -66,6 +68,58 @@ def test_a_good_log_is_silent_and_usable():
     assert heard == []
     assert learned.diagnostics.failing == ()
     np.testing.assert_allclose(learned.noise, 0.02, rtol=0.2)
+
+
+def runs_from(angles, noise=0.01):
+    """Runs of a pendulum that is released from these angles, by SciPy."""
+    t, rng = np.linspace(0, 8, 60), np.random.default_rng(0)
+    options = {"t_eval": t, "rtol": 1e-10, "atol": 1e-10}
+    paths = [
+        solve_ivp(lambda _, x: [x[1], -np.sin(x[0])], (0, 8), [angle, 0.0], **options).y.T
+        for angle in angles
+    ]
+    return hk.Runs([t] * len(paths), [x + noise * rng.standard_normal(x.shape) for x in paths])
+
+
+def test_energies_are_compared_with_what_noise_leaves_of_one():
+    X = np.random.default_rng(0).uniform(-2, 2, (80, 2))
+    Y = np.stack([X[:, 1], -np.sin(X[:, 0])], 1)
+    field = hk.fit(K, X, Y, regularization=1e-10)
+    fit = SimpleNamespace(
+        scale=np.ones(2), noise=np.array([0.01, 0.02]), kept=np.ones(2),
+        driven=False, is_disturbed=False, pushed=(),
+    )  # fmt: skip
+    paths = runs_from([1.2, 1.1], noise=0.0).host_arrays()[1]
+    H = np.array([-np.cos(1.2), -np.cos(1.1)])
+    some = np.concatenate([x[np.linspace(0, 59, 8).astype(int)] for x in paths])
+    slopes = np.stack([np.sin(some[:, 0]), some[:, 1]], 1)
+    one = np.sqrt(np.mean(np.sum((slopes * fit.noise) ** 2, axis=1)) / 60)
+    assert energies(field, fit, paths) == pytest.approx(H.std() / one, rel=1e-3)
+    other = {"kept": np.array([0.0, 1.0])}, {"is_disturbed": True}
+    alone, pushed = (SimpleNamespace(**vars(fit) | each) for each in other)
+    assert energies(field, alone, paths) == 0.0
+    assert energies(field, pushed, paths) is None
+    apart = hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0) + hk.Select(hk.Gaussian(1.0), 1))
+    assert energies(hk.fit(apart, X, Y, regularization=1e-10), fit, paths) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("angles", "apart", "failing"),
+    [([1.2], False, ("energies",)), ([1.2, 1.2], False, ("energies",)),
+     ([1.2, 1.1], False, ()), ([1.2], True, ())],
+)  # fmt: skip
+def test_runs_of_one_energy_determine_a_field_that_is_separable_alone(angles, apart, failing):
+    whole, parts = hk.Gaussian(1.0), [hk.Select(hk.Gaussian(1.0), i) for i in (0, 1)]
+    kernel = hk.Symplectic(parts[0] + parts[1] if apart else whole)
+    learned, heard = learn_and_listen(kernel, runs_from(angles))
+    assert learned.diagnostics.failing == failing
+    assert len(heard) == len(failing)
+    x = jnp.array([[0.2, 0.2], [-0.8, 0.8], [0.0, 0.6]])  # inside the orbit
+    error = np.abs(
+        np.asarray(jax.vmap(learned.field)(x)) - np.stack([x[:, 1], -jnp.sin(x[:, 0])], 1)
+    )
+    assert (error.max() > 0.04) == bool(failing)
 
 
 @pytest.mark.slow

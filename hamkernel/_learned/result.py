@@ -260,7 +260,6 @@ class Learned(AbstractLearned):
             ("process noise", numbers(self.process_noise) if noisy else "none"),
         ]
         rows += [(name, table[name].value) for name in ("iterations", "free run") if name in table]
-        rows += [("orbits", table["orbits"].meaning)] if "orbits" in table else []
         rows += self._shortfalls
         rows.append(("next", ".plot(), .score(), .diagnostics, hk.simulate(learned.field, x0, ts)"))
         return self._headline, rows

@@ -50,6 +50,7 @@ from hamkernel._trajectories.model import Model
 from hamkernel._trajectories.quality import (
     chi_squared,
     disturbances,
+    energies,
     join_runs,
     quality,
     with_causes,
@@ -223,8 +224,7 @@ def _result(
         again: `learn` with all arguments but the runs.
     """
     mean = None if mean is None else as_pytree(mean)
-    task, now, history = end.task, end.now, end.history
-    field, data = now.field, task.data
+    task, now, data = end.task, end.now, end.task.data
     times = runs.host_arrays()[0]
     states = _fitted_states(end, times)
     noise = np.where(np.isfinite(data.noise), np.exp(np.asarray(now.model.log_noise)), np.nan)
@@ -238,16 +238,18 @@ def _result(
     fit = fit if first is end else fit._replace(**chi_squared(first, innovations_of(first)))
     fit = fit._replace(noise=noise, is_noise_known=is_noise_given)
     fit = fit._replace(process=process if given_process is None else None)
-    fit = with_causes(fit, runs, end) if fit.kept.any() else fit
-    table = diagnostics(fit, field.kernel, sample_points(data)[0])
-    if table.warning:
-        require.warn(table.warning)
     observations = as_observations(now.rows, now.model, task.mean, task.start_deviation)
     count = 1 if observations is None else sum(len(y) for _, y in observations.parts())
     regularization = jnp.asarray(1 / count)
+    field = _field(now.field, regularization)
+    if fit.kept.any():
+        fit = with_causes(fit, runs, end)._replace(energies=energies(field, fit, states))
+    table = diagnostics(fit, now.field.kernel, sample_points(data)[0])
+    if table.warning:
+        require.warn(table.warning)
     return Learned(
-        field=_field(field, regularization),
-        kernel=field.kernel,
+        field=field,
+        kernel=now.field.kernel,
         regularization=regularization,
         noise=jnp.asarray(noise),
         process_noise=jnp.asarray(process),
@@ -261,14 +263,14 @@ def _result(
         whiteness=jnp.asarray(fit.white.probability),
         widening=jnp.asarray(fit.white.widening),
         disturbance=disturbances(end, times, bool(process.any())),
-        history=tuple(history),
+        history=tuple(end.history),
         converged=table.is_usable,
         diagnostics=table,
         runs=runs,
         observations=observations,
         mean=mean,
         evidence=Evidence(
-            now.model, field.points, now.rows, task.start_deviation, data.scale, is_free
+            now.model, now.field.points, now.rows, task.start_deviation, data.scale, is_free
         ),
         again=again,
     )

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from hamkernel._learned.diagnostics import FOLLOWED, FitQuality
 from hamkernel._learned.free_run import error_over_constant, stretches_of_swings
 from hamkernel._learned.whiteness import whiteness
+from hamkernel._machine import compiled_by_size
 from hamkernel._runs.preprocessing import (
     PreprocessedRun,
     decide,
@@ -91,6 +92,38 @@ def chi_squared(end: End, z: Float[np.ndarray, "S K n"]) -> dict[str, Any]:
     free = float((np.asarray(end.now.rows.counts) > 0).sum())
     mean = float((z**2).sum()) / max(free, 1.0)
     return {"chi_squared": mean if np.isfinite(mean) else np.inf, "free": free}
+
+
+def energies(field: Any, fit: FitQuality, paths: list[Float[np.ndarray, "T n"]]) -> float | None:
+    """How far the energies of the runs are apart, in standard deviations of one energy.
+
+    A run of N samples with noise σ determines its energy to |σ ∇H|/√N. Only runs in the plane are
+    asked: six runs of one energy determine Hénon and Heiles's field as well as runs of many. None
+    is asked either where the kernel has no function φ(H) of the energy, or where process noise
+    changes the energy.
+    """
+    K, n = field.kernel, len(fit.scale)
+    if n != 2 or not K.conserves or K.takes_inputs or field.mean is not None:
+        return None
+    if fit.driven or fit.is_disturbed or fit.pushed:
+        return None
+    if all(len(support) == 1 for k in K.scalar_kernels for support in k.supports(n)):
+        return None
+    paths = [x for x, share in zip(paths, fit.kept, strict=True) if share > 0]
+    if len(paths) == 1:
+        return 0.0
+    some = np.array([x[np.linspace(0, len(x) - 1, 8).astype(int)] for x in paths])
+    noise = np.diag(np.nan_to_num(fit.noise))  # the noise of each coordinate in turn
+    around = some[:, :, None, None] + np.stack([noise, -noise], 1)  # runs, samples, n, signs, n
+    plus, minus = np.moveaxis(np.asarray(_energies(field, jnp.asarray(around))), -1, 0)
+    change = np.sum(((plus - minus) / 2) ** 2, axis=2)
+    one = np.mean(np.mean(change, axis=1) / np.array([len(x) for x in paths])) ** 0.5
+    return float(np.std(np.mean(plus + minus, axis=(1, 2)) / 2) / one)
+
+
+@compiled_by_size
+def _energies(field: Any, X: Float[Array, "*shape n"]) -> Float[Array, "*shape"]:
+    return jnp.vectorize(field.hamiltonian, signature="(n)->()")(X)
 
 
 def with_causes(fit: FitQuality, runs: Runs, end: End) -> FitQuality:
