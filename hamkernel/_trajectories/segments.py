@@ -132,7 +132,7 @@ def windows(rows: LinearisedSegments, samples: int) -> LinearisedSegments:
     a pendulum with friction .2 from six runs of 240 samples, for four seeds:
 
         windows of 12 samples     .222  .191  .206  .217
-        windows of 192 samples    .197  .199  .197  .197   (in the same time)
+        windows of 48 samples     .197  .200  .197  .199
         all rows                  .199  .199  .198  .200
 
     The runs are `logs(seed, samples=240, step=6)` in `tests/test_learn_inputs.py`.
