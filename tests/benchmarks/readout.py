@@ -12,8 +12,8 @@ states it takes smoothed differences, or the weak form, integrals over 200 windo
 
 Five seeds, 122 states, exact at noise of 1, 5 and 10 %: readout 1.0, 1.0, 1.0; PySINDy 2.1 with
 smoothed differences 1.0, 0.6, 0.6, in its weak form 1.0, 0.8, 0.4.
-Median errors of the coefficients, three seeds: .06, .31, .62 % there, .26, 1.3, 2.6 % with 60
-velocities, all exact too.
+Median errors of the coefficients: .07, .34, .67 % there, .16, .78, 1.6 % with 60 velocities, all
+exact too.
 """
 
 import argparse
