@@ -23,8 +23,8 @@ from hamkernel._runs.smoothing import Coordinate, interpolate, processes, smooth
 
 # rows · columns² of a solve: 1e10 takes 1 to 2 s. If the residuals ask for more landmarks, a solve
 # may take 5e10, up to 10 s (`tests/benchmarks/capacity.py`):
-#     20 runs of 50 samples, n = 8:  128 landmarks, field error .0086; 256 take 6.5 s
-#     400 runs, double pendulum:     160 landmarks, rollout error .033; 640: .0044
+#     20 runs of 50 samples, n = 8:  128 landmarks, field error .0087; 256 take 6.5 s
+#     400 runs, double pendulum:     160 landmarks, rollout error .033; 640: .0042
 _WORK, _MOST_WORK = 1e10, 5e10
 # Points of the paths from which we take search boxes, and landmarks if there are fewer intervals.
 _POINTS = 1024
