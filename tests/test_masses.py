@@ -40,7 +40,11 @@ def test_the_gram_is_that_of_momenta_between_the_masses():
     expected = np.einsum("ab,ibjc,cd->iajd", inverse, inner, inverse)
     np.testing.assert_allclose(hk.gram(K, X, Z), expected, atol=1e-12)
     np.testing.assert_allclose(K.masses, [1.0, RATIO])
-    assert repr(K) == f"UnknownMasses({hk.Symplectic(G)!r}, masses=[2.5])"
+    assert repr(K) == f"UnknownMasses({hk.Symplectic(G)!r}, masses=[1, 2.5])"
+    full = hk.UnknownMasses(hk.Symplectic(G), [[2.0, 0.5], [0.5, 3.0]])
+    assert repr(full) == f"UnknownMasses({hk.Symplectic(G)!r}, masses=[[1, 0.25], [0.25, 1.5]])"
+    bodies = hk.UnknownMasses(hk.Symplectic(G), [2.0, 3.0], labels=(0, 0, 1))
+    assert repr(bodies).endswith("masses=[1, 1.5], labels=(0, 0, 1))")
 
 
 M = np.array([[1.0, 0.4], [0.4, 2.5]])

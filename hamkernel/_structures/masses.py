@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 from hamkernel import _require as require
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, Point, Points
 from hamkernel._kernels.symmetry import LinearMap
-from hamkernel._show import describe
+from hamkernel._show import call, describe, text
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 
 
@@ -85,7 +85,13 @@ class UnknownMasses(AbstractMatrixKernel):
         self.log_masses = jnp.log(guess[1:] / guess[0])
 
     def __repr__(self) -> str:
-        return describe(self, positional=("kernel",))
+        if not eqx.is_array(self.log_masses):
+            return describe(self, positional=("kernel",))
+        masses = text(self._of_bodies)
+        if self.coupling is not None:
+            masses = f"[{', '.join(map(text, self.masses))}]"
+        labels = [] if self.labels is None else [f"labels={self.labels}"]
+        return call("UnknownMasses", [text(self.kernel), f"masses={masses}", *labels])
 
     @property
     def masses(self) -> Float[Array, " m"] | Float[Array, "m m"]:
@@ -97,9 +103,14 @@ class UnknownMasses(AbstractMatrixKernel):
         return jnp.einsum("ab,b,cb->ac", L, D, L)
 
     @property
+    def _of_bodies(self) -> Float[Array, " b"]:
+        """The masses of the bodies divided by the first of them."""
+        return jnp.exp(jnp.pad(self.log_masses, (1, 0)))
+
+    @property
     def _diagonal(self) -> Float[Array, " m"]:
         """The diagonal of D, whose first entry is 1."""
-        D = jnp.exp(jnp.pad(self.log_masses, (1, 0)))
+        D = self._of_bodies
         return D if self.labels is None else D[np.array(self.labels)]
 
     def _triangle(self, dtype: Any) -> Float[Array, "m m"]:
