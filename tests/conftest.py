@@ -4,7 +4,6 @@ import collections
 import gc
 import os
 import pathlib
-import tempfile
 import warnings
 import zlib
 
@@ -19,12 +18,8 @@ os.environ["FAST_XLA_FLAGS"] = (
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 )
 os.environ.setdefault("XLA_FLAGS", os.environ["FAST_XLA_FLAGS"])
-# Each program is compiled once, for both workers, and for both sides of `clear_caches` below: 15 %
-# less CPU time of six files of tests that learn. Smaller programs are not worth the writing.
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-    _programs = tempfile.TemporaryDirectory()
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = _programs.name
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+# JAX hashes each program for a cache on disk, also where no such cache is.
+os.environ.setdefault("JAX_ENABLE_COMPILATION_CACHE", "false")
 
 import jax
 import numpy as np

@@ -87,7 +87,7 @@ class UnknownMasses(AbstractMatrixKernel):
     def __repr__(self) -> str:
         if not eqx.is_array(self.log_masses):
             return describe(self, positional=("kernel",))
-        masses = text(self._of_bodies)
+        masses = text(self._ratios)
         if self.coupling is not None:
             masses = f"[{', '.join(map(text, self.masses))}]"
         labels = [] if self.labels is None else [f"labels={self.labels}"]
@@ -103,14 +103,14 @@ class UnknownMasses(AbstractMatrixKernel):
         return jnp.einsum("ab,b,cb->ac", L, D, L)
 
     @property
-    def _of_bodies(self) -> Float[Array, " b"]:
+    def _ratios(self) -> Float[Array, " b"]:
         """The masses of the bodies divided by the first of them."""
         return jnp.exp(jnp.pad(self.log_masses, (1, 0)))
 
     @property
     def _diagonal(self) -> Float[Array, " m"]:
         """The diagonal of D, whose first entry is 1."""
-        D = self._of_bodies
+        D = self._ratios
         return D if self.labels is None else D[np.array(self.labels)]
 
     def _triangle(self, dtype: Any) -> Float[Array, "m m"]:
