@@ -552,7 +552,7 @@ def _energies(fit: FitQuality) -> Diagnostic | None:
     angles of 1.2 and 1.2 (1 − δ). For δ = 0, .01, .02 and .1 their energies are .15, 3.4, 7.7 and
     42 deviations apart, and the median error of the field inside the larger orbit is 2.6, 2.3, 1.5
     and 1.0 of its own deviations. With noise of .05 and δ = 0, .02, .05 and .1 energies are .19,
-    1.3, 3.5 and 7.6 apart, errors 1.5, 1.5, 1.1 and .8 (`tests/test_verdicts.py`, one seed).
+    1.3, 3.5 and 7.6 apart, errors 1.5, 1.5, 1.1 and .8 (`tests/benchmarks/verdicts.py --energies`).
     """
     if fit.energies is None:
         return None

@@ -2,11 +2,14 @@
 
     python tests/benchmarks/verdicts.py [name …] [--seed 0]
     python tests/benchmarks/verdicts.py --good 30
+    python tests/benchmarks/verdicts.py --energies
 
 Each line has the verdict, the error of a free run from an unseen start over the deviation of the
 motion, three rows of the diagnostics, and the names of those that fall short. SciPy simulates the
 logs. `--good` counts refusals among that many short logs of pendula and double wells, which a field
-describes.
+describes. `--energies` learns from two runs of a pendulum whose amplitudes differ by a share δ, and
+prints how far their energies are apart, and the median error of the field inside the larger orbit
+in deviations of the posterior.
 """
 
 import argparse
@@ -167,13 +170,37 @@ def count_refusals(count):
     print(f"{len(refused)} of {count} good logs refused: {refused}")
 
 
+def compare_energies(seed):
+    ts = np.linspace(0, 8, 60)
+    x = np.stack(np.meshgrid(*[np.linspace(-1.2, 1.2, 13)] * 2), -1).reshape(-1, 2)
+    x = x[x[:, 1] ** 2 / 2 - np.cos(x[:, 0]) < -np.cos(1.2)]
+    true = np.stack([x[:, 1], -np.sin(x[:, 0])], 1)
+    print("| noise | δ | energies apart | median error |")
+    print("|---|---|---|---|")
+    for noise, shares in ((0.01, (0, 0.01, 0.02, 0.1)), (0.05, (0, 0.02, 0.05, 0.1))):
+        for share in shares:
+            rng = np.random.default_rng(seed)
+            starts = [[1.2, 0.0], [1.2 * (1 - share), 0.0]]
+            paths = [path(lambda x: [x[1], -np.sin(x[0])], start, ts) for start in starts]
+            found = learned(
+                symplectic(), ts, [y + noise * rng.standard_normal(y.shape) for y in paths]
+            )
+            error = np.abs(np.asarray(jax.vmap(found.field)(jnp.asarray(x))) - true)
+            band = np.asarray(jax.vmap(found.posterior.deviation)(jnp.asarray(x)))
+            apart = found.diagnostics["energies"].value
+            print(f"| {noise} | {share} | {apart} | {np.median(error / band):.1f} |", flush=True)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("names", nargs="*")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--good", type=int, default=0)
+    parser.add_argument("--energies", action="store_true")
     options = parser.parse_args()
-    if options.good:
+    if options.energies:
+        compare_energies(options.seed)
+    elif options.good:
         count_refusals(options.good)
     else:
         table(options.names, options.seed)
